@@ -9,7 +9,6 @@ estimated beside the coefficients, and what no driving tells is left out of the 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ from rov_ident.model.coefficients import parse
 from rov_ident.model.equations import Array
 from rov_ident.model.thruster_allocation import is_known
 from rov_ident.offline.archive import Archive, total
-from rov_ident.offline.maximum_likelihood import LIKELY, NO_ROWS, assumed, one_pass, thrust_errors
+from rov_ident.offline.maximum_likelihood import LIKELY, assumed, with_thrust_errors
 from rov_ident.offline.newton import inverse_of
 from rov_ident.reports.result import NORMAL, Figure, Shown, as_json
 from rov_ident.reports.table import PLUS_MINUS, Table
@@ -206,7 +205,7 @@ def propose(
             continue
         run = closed_loop_manoeuvres.dive(config, found[0], duration, limits, Suite())
         samples = smoothed(joined(list(samples_of(about, run, velocity))), about)
-        information = one_pass(samples, *_model(about)).information
+        information = with_thrust_errors(samples, *_model(about)).information
         std = np.array([p.std for p in known_after(about, now + information)])
         candidates.append(Candidate(*found, information, duration, limits))
         predicted.append(std / size)
@@ -254,11 +253,11 @@ def supposed(config: Config, velocity: bool = True) -> Config:
 
 
 def _model(about: Config) -> tuple[Any, ...]:
-    """The arguments of :func:`one_pass` for what is `supposed`, and the thrust of each axis."""
+    """The arguments of :func:`with_thrust_errors` for what is `supposed`."""
     prior = prior_of(about, effects=True)
     effects, axis_std = theta_of(about)[len(about.model.theta) :], axis_std_of(about, prior.names)
-    noise, of_thrust = assumed(about, LIKELY), partial(thrust_errors, axis_std=axis_std)
-    return about.dynamics, prior.estimated, noise, None, np.inf, effects, NO_ROWS, of_thrust
+    noise = assumed(about, LIKELY)
+    return about.dynamics, prior.estimated, noise, None, np.inf, effects, axis_std
 
 
 def _no_information(about: Config) -> Array:
@@ -270,7 +269,7 @@ def _no_information(about: Config) -> Array:
 def information_of(bags: Archive, about: Config) -> Array:
     """Information (n + q, n + q) in the motion of bags that were read by what is `supposed`: about
     all that is estimated, then about q errors of the thrust of single axes, which are not."""
-    return total(bags.each(one_pass, *_model(about))).information
+    return total(bags.each(with_thrust_errors, *_model(about))).information
 
 
 def covariance_of(about: Config, information: Array) -> Array:

@@ -31,7 +31,7 @@ these noise levels. Coefficients' covariances are not taken from it alone, as re
 coloured: the covariance of the accumulated score stands between two inverse informations.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
@@ -147,9 +147,6 @@ class _Equations(NamedTuple):
     free: NDArray[np.bool_]  # (6,)
 
 
-Considered = Callable[[Samples, Model], Array]
-
-
 class Pass(NamedTuple):
     """One pass of the filter over samples; sums over bags are sums of these.
 
@@ -175,15 +172,15 @@ def one_pass(
     gate: float = np.inf,
     effects: Array = _NONE,
     out: Array = NO_ROWS,
-    considered: Considered | None = None,
+    considered: Array | None = None,
 ) -> Pass:
     """The likelihood of samples (k,) of SAMPLE at the model's values, with its derivatives.
 
     ``estimated`` (n,) are indices into theta, behind which come the values (p,) of parameters of
     ``effects``, as in the columns of the samples; components not ``free`` (6,) follow the
     measurement, and those of which no wrench is known. ``out`` (3, k, 6), unless it is empty, is
-    filled with :class:`Innovations`. ``considered`` gives what a unit of each of q errors adds to
-    the wrench in each sample (k, 6, q): these are then q more parameters behind the others.
+    filled with :class:`Innovations`. ``considered`` (k, 6, q): what a unit of each of q errors adds
+    to the wrench of each sample; these are then q more parameters behind the others.
     """
     known = free_axes(samples)
     free = known if free is None else free & known
@@ -194,9 +191,9 @@ def one_pass(
         sides = sides.copy()
         sides[:, :6][:, noise.untaught.T] = 0.0
     if considered is not None:
-        wrench = considered(samples, model)
-        errors, size = np.zeros((len(samples), 13, wrench.shape[2])), wrench.shape[2]
-        errors[:, :6] = wrench
+        size = considered.shape[2]
+        errors = np.zeros((len(samples), 13, size))
+        errors[:, :6] = considered
         estimated = np.append(estimated, len(model.theta) + len(effects) + np.arange(size))
         sides = np.broadcast_to(sides, (len(samples), *sides.shape[1:]))
         effects, sides = np.append(effects, np.zeros(size)), np.concatenate([sides, errors], axis=2)
@@ -216,16 +213,25 @@ def one_pass(
     return Pass(information, score, scatter, float(sums[0]), int(sums[1]), int(sums[2]))
 
 
-def thrust_errors(samples: Samples, model: Model, axis_std: Array) -> Array:
-    """(k, 6, q): by how much the thrust of each axis is off by the standard deviations ``axis_std``
-    (q,), relative to it, of six axes or of none."""
+def with_thrust_errors(
+    samples: Samples,
+    model: Model,
+    estimated: NDArray[np.int64],
+    noise: Noise,
+    free: NDArray[np.bool_] | None,
+    gate: float,
+    effects: Array,
+    axis_std: Array,
+) -> Pass:
+    """:func:`one_pass`, with errors of the thrust of each axis by the standard deviations
+    ``axis_std`` (q,), relative to it, of six axes or of none."""
     thrust, axes = samples["wrench"] - samples["surroundings"], np.arange(len(axis_std))
     errors = np.zeros((len(samples), 6, len(axes)))
     errors[:, axes, axes] = axis_std * thrust[:, axes]
-    return errors
+    return one_pass(samples, model, estimated, noise, free, gate, effects, considered=errors)
 
 
-def tilt_errors(samples: Samples, model: Model) -> Array:
+def _tilt_errors(model: Model, samples: Samples) -> Array:
     """(k, 6, 2): what an error of the attitude in roll and in pitch, per radian, does to the wrench
     of weight and buoyancy."""
     turned = np.cross(samples["down"][:, None], np.eye(3)[:2])  # (k, 2, 3)
@@ -266,25 +272,24 @@ def by_stretch(
     seconds, n = float(samples["dt"].sum()), len(estimated)
     count = constancy.stretches_of(seconds)
     nu = innovations(samples, model, noise, free, gate, effects).nu
-    beside = np.concatenate([_late_drag(model, nu, samples), tilt_errors(samples, model)], axis=2)
+    beside = np.concatenate([_late_drag(model, nu, samples), _tilt_errors(model, samples)], axis=2)
     found = [
-        one_pass(
-            part, model, estimated, noise, free, gate, effects, considered=lambda *_, own=own: own
-        )
+        one_pass(part, model, estimated, noise, free, gate, effects, considered=own)
         for part, own in zip(
             np.array_split(samples, count), np.array_split(beside, count), strict=True
         )
     ]
-    n += 6
     informations = np.array([p.information for p in found])
+    tilt = informations[:, :n, n + 6 :]  # (C, n, 2)
     # The covariance of the means of an error over two stretches, as long as h times it lasts.
     h = seconds / count / max(float(np.mean(samples["tilt_lasts"])), 1e-3)
     between = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) - 1.0
     alike = np.exp(-h * np.maximum(between, 0.0)) * (1.0 - np.exp(-h)) ** 2
     alike[between < 0.0] = 2.0 * (h + np.exp(-h) - 1.0)
     alike *= float(np.mean(samples["tilt_variance"])) / h**2
-    by_tilt = np.einsum("cia,dja,cd->ij", *2 * (informations[:, : n - 6, n:],), alike)
-    return Stretches(np.array([p.score[:n] for p in found]), informations[:, :n, :n], by_tilt)
+    by_tilt = np.einsum("cia,dja,cd->ij", tilt, tilt, alike)
+    scores = np.array([p.score[: n + 6] for p in found])
+    return Stretches(scores, informations[:, : n + 6, : n + 6], by_tilt)
 
 
 class Innovations(NamedTuple):
@@ -555,9 +560,9 @@ def maximise(
     asked, inverse = theta.copy(), inverse_of(curvature[np.ix_(~held, ~held)])
     asked[~held] += inverse @ slope[~held]
     n = len(theta)
-    by_thrust = partial(thrust_errors, axis_std=axis_std_of(config, prior.names))
-    beside = model_at(theta), estimated, noise, free, gate, theta[~own], NO_ROWS, by_thrust
-    errors = total(each(one_pass, *beside)).information[:n, n:]
+    axis_std = axis_std_of(config, prior.names)
+    beside = model_at(theta), estimated, noise, free, gate, theta[~own], axis_std
+    errors = total(each(with_thrust_errors, *beside)).information[:n, n:]
     by_axis = np.zeros_like(errors)
     by_axis[~held] = inverse @ errors[~held]
     reading_noise = np.where(noisy, readings / samples, 0.0)
