@@ -110,8 +110,8 @@ def leaking(vehicle, truth, rng):
     return np.hstack([force, np.cross(vehicle.cob, force)]), lost
 
 
-def late_drag(vehicle, truth, rng):
-    """(N, 6): drag of which a tenth follows the motion late by a second or two."""
+def remembering(vehicle, truth, rng):
+    """(N, 6): a tenth of the drag more, until the water follows the motion in a second or two."""
     nu = truth.state[:, 7:]
     drag = np.zeros_like(nu)
     for name, value in vehicle.theta.items():
@@ -124,7 +124,7 @@ def late_drag(vehicle, truth, rng):
     return 0.1 * (drag - late), None
 
 
-HIDDEN = {"leak": leaking, "memory": late_drag}
+HIDDEN = {"leak": leaking, "memory": remembering}
 
 
 @pytest.mark.parametrize(

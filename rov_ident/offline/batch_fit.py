@@ -448,8 +448,8 @@ def _of_memory(found: _Stage) -> list[Test]:
     return [
         Test(
             f"memory of the drag: {axis}", abs(z), constancy.UNLIKELY,
-            f"the drag along {axis} seems to follow the motion late, which added mass takes up: "
-            f"{CAUSE}",
+            f"the drag along {axis} seems to depend on the past motion, too, which added mass "
+            f"takes up: {CAUSE}",
         )
         for axis, z in zip(AXES, found.memory.tolist())
         if z != 0.0

@@ -86,7 +86,7 @@ _NOISE_ITERATIONS = 20  # each by a factor of e^1.5 at most: from the first leve
 _NEAR = 0.05  # squared standard deviations of noise levels from the most likely ones
 _SMALLEST = 1e-4  # floor of the process noise over the axis's working wrench: as good as none
 _ANY_DEPTH = 1e6  # m2; of a depth that nothing is known of
-_MEMORY = 1.0  # s; over which the water remembers, some lengths of a hull at its working speed
+_MEMORY = 1.0  # s; over which drag may depend on the past: a length of a hull at working speed
 _NONE = np.zeros(0)
 NO_ROWS = np.zeros((3, 0, 6))
 LIKELY = 3e-3  # a choice: the same before a fit of the noise, stated in docs/offline.md
@@ -240,7 +240,7 @@ def _tilt_errors(model: Model, samples: Samples) -> Array:
 
 
 def _late_drag(model: Model, nu: Array, samples: Samples) -> Array:
-    """(k, 6, 6): what the drag of each axis would be more if all of it followed the motion late, at
+    """(k, 6, 6): what the drag of each axis would be more if all of it were behind the motion, at
     the filtered velocity nu (k, 6) before each sample, which nothing in that sample has changed."""
     drag = model.damping_force(np.nan_to_num(nu))
     late, axes = np.zeros((len(nu), 6, 6)), np.arange(6)
@@ -448,7 +448,7 @@ class Likelihood:
     reading, on axes that would teach that; zero on others.
     ``slope`` (2, n): the largest slope of each parameter within a record, in normal deviates, and
     by how much it changes in that record.
-    ``memory`` (6,): whether the drag of each axis follows the motion late, in normal deviates.
+    ``memory`` (6,): whether the drag of each axis depends on the past motion, in normal deviates.
     ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
     and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
     (a lag would smooth the noise away).
