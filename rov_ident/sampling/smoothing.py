@@ -9,9 +9,9 @@ level; Durbin and Koopman 2012, ch. 2 to 4)::
     q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + a + v
     a[k] = r a[k - 1] + white noise,       r = exp(-dt / T)
 
-v's variance is half that of the differences of successive measurements; a's the one of highest
-likelihood, and so is the factor by which w's is that of the rates' noise, as integration has errors
-of its own. The drift of the rates, a slow random walk too, is one more state.
+v's variance is half that of the differences of successive measurements. a's is the likeliest one,
+and so is the factor by which w's is that of the rates' noise, as integration has errors of its own.
+The drift of the rates, a slow random walk too, is one more state.
 
 The error of the level that is left, of a and w, has at the angular frequency f the density that
 two sources of the densities q / f^2 (of d, by the rates) and A (of a) leave together::
@@ -41,6 +41,10 @@ from rov_ident.sampling.sample import stretches
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
 # odometry's rates have told it to a tenth of their own noise
 _FACTORS = np.array([1.0, 1.7, 3.0, 5.5, 10.0, 30.0, 100.0, 1000.0])
+_KNOWN = math.log(
+    3.0
+)  # prior deviation of a factor's logarithm: in two minutes of an attitude that
+# wanders, a walk of a gyro that is five times as noisy as stated may be as likely
 _LASTING = np.append(0.0, np.geomspace(0.1, 1.6, 9))  # of the stated deviation of an attitude
 _FEWEST = 10  # measured attitudes; fewer do not tell their noise
 
@@ -100,6 +104,7 @@ def _likeliest_level(
     for factor, share in itertools.product(_FACTORS, _LASTING):
         lasting = (share * stated) ** 2
         level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
+        cost += (math.log(factor) / _KNOWN) ** 2
         if cost < best:
             best, found = cost, (level, factor, lasting)
     level, factor, lasting = found
