@@ -317,6 +317,7 @@ def test_coriolis_of_the_rigid_body_is_fossens_closed_form(nu):
 def test_damping_matrix_times_velocity_is_the_sum_of_the_named_terms(nu):
     force, size = damping_force(VALUES, nu)
     same(FULL.damping_matrix(nu) @ nu, -force, size)
+    same(FULL.damping_force(nu), force, size)
 
 
 @given_states

@@ -180,15 +180,10 @@ class Model:
 
     def damping_force(self, nu: Array) -> Array:
         """d(nu) (..., 6) at nu (..., 6), without inputs."""
+        massless, at_rest = np.zeros((6, 6)), np.zeros(len(INPUTS))
         velocity = _vector(nu).reshape(-1, 6)
-        states = extended_states(velocity, np.zeros((len(velocity), len(INPUTS))))
-        out = np.zeros((len(states), 6))
-        for c, value in zip(self.coefficients, self.theta, strict=True):
-            if c.is_added_mass or c.inputs:
-                continue
-            acts = velocity[:, c.velocity] < 0.0 if c.is_one_sided else 1.0
-            out[:, c.row] += acts * value * states[:, c.left] * states[:, c.right]
-        return out.reshape(np.shape(nu))
+        out = [force_of_one(self.structure, massless, self.theta, v, at_rest) for v in velocity]
+        return -np.reshape(out, np.shape(nu))
 
     def _force(self, nu: Array, inputs: Array | None) -> Array:
         given = np.zeros(len(INPUTS)) if inputs is None else _vector(inputs)

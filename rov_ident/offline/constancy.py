@@ -58,15 +58,10 @@ def slopes(scores: Array, informations: Array, whole: Array) -> Array:
         beside = -scaled_solve(whole, columns.sum(axis=0), ridge=1e-12)
         along = beside + time[:, None] * np.eye(n)[i]  # (C, n): what a unit of slope changes
         weight = np.einsum("ca,cab,cb->c", along, informations, along)
-        known = float(weight.sum())
-        telling = known**2 / max(float(np.sum(weight**2)), 1e-300)
-        if telling < _FEWEST:
-            continue
-        slope = float(time @ scores[:, i]) / known
-        left = scores - slope * np.einsum("cab,cb->ca", informations, along)
-        own = np.sum(along * left, axis=1)
-        scatter = max(1.0, float(np.sum(own**2)) * count / (count - 2) / known)
-        found[:, i] = _normal(slope * np.sqrt(known / scatter), telling - 1.0), slope
+        slope = float(time @ scores[:, i]) / max(float(weight.sum()), 1e-300)
+        own = np.sum(along * scores, axis=1)
+        unlikely = _unlikely(slope, own, weight, 2)
+        found[:, i] = unlikely, slope * (unlikely != 0.0)
     return found
 
 
@@ -84,15 +79,23 @@ def lacking(scores: Array, informations: Array, whole: Array) -> Array:
         along[:n] = -scaled_solve(whole, informations[:, :n, n + i].sum(axis=0), ridge=1e-12)
         along[n + i] = 1.0
         own, weight = scores @ along, informations @ along @ along
-        known = float(weight.sum())
-        telling = known**2 / max(float(np.sum(weight**2)), 1e-300)
-        if telling < _FEWEST:
-            continue
-        score = float(scores[:, n + i].sum())  # all others' are zero with the prior's
-        left = own - score / known * weight
-        scatter = max(1.0, float(np.sum(left**2)) * count / (count - 1) / known)
-        found[i] = _normal(score / np.sqrt(known * scatter), telling - 1.0)
+        # all others' scores are zero with the prior's
+        change = float(scores[:, n + i].sum()) / max(float(weight.sum()), 1e-300)
+        found[i] = _unlikely(change, own, weight, 1)
     return found
+
+
+def _unlikely(change: float, scores: Array, weight: Array, spent: int) -> float:
+    """The normal deviate that is as unlikely by chance as a ``change`` of one parameter, of whose
+    ``scores`` (C,) in stretches it explains its ``weight`` (C,) each and leaves the rest; ``spent``
+    of C are the degrees of freedom that it has taken. Zero where too few stretches tell."""
+    count, known = len(scores), float(weight.sum())
+    telling = known**2 / max(float(np.sum(weight**2)), 1e-300)
+    if telling < _FEWEST:
+        return 0.0
+    left = scores - change * weight
+    scatter = max(1.0, float(np.sum(left**2)) * count / (count - spent) / known)
+    return _normal(change * np.sqrt(known / scatter), telling - 1.0)
 
 
 def _normal(t: float, freedom: float) -> float:

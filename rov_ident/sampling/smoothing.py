@@ -41,10 +41,8 @@ from rov_ident.sampling.sample import stretches
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
 # odometry's rates have told it to a tenth of their own noise
 _FACTORS = np.array([1.0, 1.7, 3.0, 5.5, 10.0, 30.0, 100.0, 1000.0])
-_KNOWN = math.log(
-    3.0
-)  # prior deviation of a factor's logarithm: in two minutes of an attitude that
-# wanders, a walk of a gyro that is five times as noisy as stated may be as likely
+_STATED = 3.0  # a factor as far from one as a standard deviation, before any data: in two minutes
+# of an attitude that wanders, a gyro five times as noisy as stated may be as likely
 _LASTING = np.append(0.0, np.geomspace(0.1, 1.6, 9))  # of the stated deviation of an attitude
 _FEWEST = 10  # measured attitudes; fewer do not tell their noise
 
@@ -104,7 +102,7 @@ def _likeliest_level(
     for factor, share in itertools.product(_FACTORS, _LASTING):
         lasting = (share * stated) ** 2
         level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
-        cost += (math.log(factor) / _KNOWN) ** 2
+        cost += (math.log(factor) / math.log(_STATED)) ** 2
         if cost < best:
             best, found = cost, (level, factor, lasting)
     level, factor, lasting = found
