@@ -137,7 +137,7 @@ def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     wrong beside a buoyancy that leaks away, and added masses up to 12 beside a drag with memory, in
     fits that were said to agree."""
     rng = np.random.default_rng([seed, 77])
-    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea()
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_rate=10.0)
     truth = sea.dive(vehicle, unknown, "six-axis", 70.0, rng)
     messages = sea.measured(truth, unknown, rng)
     file, bag = tmp_path / "vehicle.yaml", tmp_path / "dive.mcap"

@@ -9,9 +9,10 @@ level; Durbin and Koopman 2012, ch. 2 to 4)::
     q = exp(d) Q,   d[k] = d[k - 1] + w,   log(q_measured Q^-1) = d + a + v
     a[k] = r a[k - 1] + white noise,       r = exp(-dt / T)
 
-v's variance is half that of the differences of successive measurements. a's is the likeliest one,
-and so is the factor by which w's is that of the rates' noise, as integration has errors of its own.
-The drift of the rates, a slow random walk too, is one more state.
+v's variance is half that of the differences of successive measurements. A dive tells little of a's,
+and of the factor by which w's is that of the rates' noise, as integration has errors of its own:
+the level is the mean over a grid of both, by their likelihood (Bayesian model averaging). The drift
+of the rates, a slow random walk too, is one more state.
 
 The error of the level that is left, of a and w, has at the angular frequency f the density that
 two sources of the densities q / f^2 (of d, by the rates) and A (of a) leave together::
@@ -40,7 +41,7 @@ from rov_ident.sampling.sample import stretches
 
 _LOOK_AHEAD = 120.0  # s; a bias has wandered by 5 % of its prior's deviation in this time, and the
 # odometry's rates have told it to a tenth of their own noise
-_FACTORS = np.array([1.0, 1.7, 3.0, 5.5, 10.0, 30.0, 100.0, 1000.0])
+_FACTORS = np.array([0.01, 0.03, 0.1, 0.3, 1.0, 1.7, 3.0, 5.5, 10.0, 30.0, 100.0, 1000.0])
 _STATED = 3.0  # a factor as far from one as a standard deviation, before any data: in two minutes
 # of an attitude that wanders, a gyro five times as noisy as stated may be as likely
 _LASTING = np.append(0.0, np.geomspace(0.1, 1.6, 9))  # of the stated deviation of an attitude
@@ -78,7 +79,7 @@ def _smooth(part: NDArray[np.void], config: Config) -> None:
     t = part["t"]
     # a compass has errors of another size
     (tilt, variance, lasts), (heading, *_) = (
-        _likeliest_level(off[:, axes], walk, np.diff(t[seen]), config) for axes in ([0, 1], [2])
+        _mean_level(off[:, axes], walk, np.diff(t[seen]), config) for axes in ([0, 1], [2])
     )
     part["tilt_variance"], part["tilt_lasts"] = variance, lasts
     error = np.column_stack([tilt, heading])
@@ -89,7 +90,7 @@ def _smooth(part: NDArray[np.void], config: Config) -> None:
     _take_slopes(down, part["nu"][:, 3:], np.maximum(part["dt"], 1e-6), part["down_slope"])
 
 
-def _likeliest_level(
+def _mean_level(
     off: Array, walk: Array, between: Array, config: Config
 ) -> tuple[Array, float, float]:
     """The level (n, m) of what is off (n, m), n - 1 times ``between`` [s] one and the next; and
@@ -98,17 +99,24 @@ def _likeliest_level(
     noise = 0.5 * float(robust_std(np.diff(off, axis=0), axis=None)) ** 2 + 1e-12
     keep = np.exp(-between / ATTITUDE_LASTS)
     bias = config.imu.gyro_bias_std**2 * np.array([1.0, 1.0 / BIAS_TIME])
-    stated, best, found = config.odometry.attitude_std, np.inf, (off, 1.0, 0.0)
+    best, weights = np.inf, 0.0
+    level, errors = np.zeros_like(off), np.zeros(2)
     for factor, share in itertools.product(_FACTORS, _LASTING):
-        lasting = (share * stated) ** 2
-        level, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
+        lasting = (share * config.odometry.attitude_std) ** 2
+        by_these, cost = _local_level(off, noise, factor * walk, lasting, keep, between, bias)
         cost += (math.log(factor) / math.log(_STATED)) ** 2
-        if cost < best:
-            best, found = cost, (level, factor, lasting)
-    level, factor, lasting = found
-    density = 2.0 * ATTITUDE_LASTS * lasting
-    lasts = math.hypot(ATTITUDE_LASTS, math.sqrt(density * between.sum() / (factor * walk.sum())))
-    return level, 0.5 * density / lasts, lasts
+        density = 2.0 * ATTITUDE_LASTS * lasting
+        walked = density * between.sum() / (factor * walk.sum())
+        variance = 0.5 * density / math.hypot(ATTITUDE_LASTS, math.sqrt(walked))
+        if cost < best:  # weights are relative to the likeliest
+            before = math.exp(0.5 * (cost - best))
+            best, weights, level, errors = cost, before * weights, before * level, before * errors
+        weight = math.exp(0.5 * (best - cost))
+        weights += weight
+        level += weight * by_these
+        errors += weight * np.array([variance, density])
+    variance, density = errors / weights
+    return level / weights, variance, 0.5 * density / max(variance, 1e-300)
 
 
 @kernel
