@@ -94,10 +94,12 @@ def test_a_parameter_that_the_model_lacks_is_told(share):
         x[:, :, 3] += x[:, :, 0]
         y = share * x[:, :, 3] + rng.standard_normal((COUNT, 100))
         informations = np.einsum("cra,crb->cab", x, x)
-        whole = informations[:, :3, :3].sum(axis=0)
-        theta = np.linalg.solve(whole, np.einsum("cra,cr->a", x[:, :, :3], y))
-        scores = np.einsum("cra,cr->ca", x, y - x[:, :, :3] @ theta)
-        found.append(constancy.lacking(scores, informations, whole)[0])
+        # at the prior's mean, which is not the likeliest value of the others
+        precision, mean = np.array([0.0, 4.0, 0.0]), np.array([0.3, 0.5, -0.2])
+        y += x[:, :, :3] @ (mean + np.array([1.0, 0.5 * rng.standard_normal(), -2.0]))
+        scores = np.einsum("cra,cr->ca", x, y - x[:, :, :3] @ mean)
+        nothing = np.zeros(3)
+        found.append(constancy.lacking(scores, informations, precision, nothing, nothing > 0.0)[0])
     beyond = np.mean(np.abs(found) > constancy.UNLIKELY)
     assert beyond > 0.7 if share else beyond <= 0.01
     assert 0.7 < np.std(found) < 1.2 if not share else np.min(found) > 0.0
@@ -157,6 +159,7 @@ def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     found = ri.fit(bag, file, "ml").consistency
     tests = {test.name: test for test in found.tests}
     assert "constancy of ocean_current.north" in tests and "memory of the drag: X" in tests
+    assert "missing term: Y_pdot" in tests
     assert "constancy of cog_offset.dx" not in tests
     late = [test.name for test in found.tests if "memory" in test.name and not test.passed]
     assert tests["constancy of buoyancy.delta"].passed == (hidden != "leak")

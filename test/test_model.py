@@ -321,6 +321,19 @@ def test_damping_matrix_times_velocity_is_the_sum_of_the_named_terms(nu):
 
 
 @given_states
+@given(nu=vectors, nu_dot=vectors)
+def test_a_term_that_is_zero_changes_nothing(nu, nu_dot):
+    """Even beside damping that drives, as noise makes it."""
+    model = build(BODY, {"X_u": -3.0, "Z_wdot": -9.0}).with_values({"X_u": 0.2})
+    wider = model.with_terms(["Y_uv", "X_wdot"])
+    assert wider.values == {"X_u": 0.2, "Z_wdot": -9.0, "Y_uv": 0.0, "X_wdot": 0.0}
+    down = np.array([0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(
+        wider.wrench(nu, nu_dot, down), model.wrench(nu, nu_dot, down), strict=True
+    )
+
+
+@given_states
 @given(phi=angles, theta=angles)
 def test_restoring_force_is_fossens_in_euler_angles(phi, theta):
     g = restoring(BODY.weight, BODY.buoyancy, BODY.cog, BODY.cob, phi, theta)

@@ -20,7 +20,7 @@ from rov_ident.core.errors import UserError, refuse_ignored, require
 from rov_ident.core.messages import DRIVE, WRENCH, Message
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.discrepancy.velocity_sensor import tests_of
+from rov_ident.discrepancy import rates_and_attitude, velocity_sensor
 from rov_ident.estimation.consistency import Test, tests_of_sensors, worst_of
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
@@ -168,7 +168,7 @@ def fit(
             found = batch_fit.fit_batch(many, given, estimator, settings, say)
         say("comparing the sensors")
         late = delays.is_late(found.given.effects)
-        found = found.with_tests(_message_tests([bag.path for bag in many.bags], given, late))
+        found = found.with_tests(_message_tests([bag.path for bag in many.bags], found, late))
         if table:
             found = _with_table_notes(found, given, table)
         estimates = dict(zip(found.names, zip(found.values, found.std, strict=True), strict=True))
@@ -205,17 +205,22 @@ def _judged(found: Fit, given: Config, validate: File, fitted: list[Path], say: 
         return dataclasses.replace(found, notes=notes, more=more, judged=curves(*runs))
 
 
-def _message_tests(paths: Sequence[Path], config: Config, late: bool) -> list[Test]:
+def _message_tests(paths: Sequence[Path], fit: Fit, late: bool) -> list[Test]:
     """Tests of sensors and clocks on the first messages of each bag: the worst result of each;
     ``late``: whether the model that was fitted has thrust or velocities that are."""
     worst: dict[str, Test] = {}
+    config = fit.given
     for path in paths:
         bag = Bag(path)
         chosen = topics.select(bag, config)
         if has_velocity(bag, chosen, config):
             heard = _once_commanded(topics.messages(bag, chosen, config), chosen)
             streams = gather(itertools.islice(heard, _COMPARED), config)
-            for test in (*tests_of(streams, config), *delays.tests_of(streams, config, late)):
+            for test in (
+                *velocity_sensor.tests_of(streams, config),
+                *rates_and_attitude.tests_of(streams, config, fit),
+                *delays.tests_of(streams, config, late),
+            ):
                 before = worst.get(test.name, test)
                 worst[test.name] = max(before, test, key=lambda t: t.value / t.limit)
     return list(worst.values())

@@ -26,7 +26,10 @@ from rov_ident.core.linalg import integral, interpolated, scaled_solve
 from rov_ident.discrepancy import sensor_choice, sensor_consistency
 from rov_ident.discrepancy.held_out import split, surely_less
 from rov_ident.discrepancy.sensor_consistency import CLUSTER, FEWEST, ROUNDS, whitened
+from rov_ident.estimation.consistency import Test
+from rov_ident.model.coefficients import ONE, parse
 from rov_ident.model.equations import Array
+from rov_ident.offline.fit import Fit
 from rov_ident.sampling.raw_streams import Streams
 
 _BIASED = 5.0  # standard deviations by which angular velocities must differ from the attitude's
@@ -53,7 +56,7 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     errors = body
     if len(streams.imu_t) > 1:  # else trapezoids leave out of quick turns what a scale would, too
         errors = [*body, *_scaled(streams.nu[:, 3:])]
-        streams = _with_gyro_set_right(streams, between, body, config)
+        streams = _with_gyro_set_right(streams, between, config)
     value, std = _apart(streams, between, errors)
     value[3:-1] *= np.abs(value[3:-1]) < _LARGEST_SCALE
     if std.any():
@@ -85,23 +88,52 @@ def agreed(streams: Streams, config: Config) -> Agreed:
     return Agreed(streams, late, may_drift)
 
 
+def scale_of(streams: Streams, config: Config, between: Array | None = None) -> Array:
+    """By how much (3,) of themselves the angular velocities of the IMU, or of an odometry without
+    one, turn further than the attitude; zero where that is not sure."""
+    between = _between(streams, config) if between is None else between
+    if len(streams.imu_t) > 1:
+        gyro = streams.gyro @ config.imu.to_body.T
+        rates = interpolated(streams.imu_t, gyro, streams.t)
+        streams = dataclasses.replace(streams, nu=np.hstack([streams.nu[:, :3], rates]))
+    body = [np.broadcast_to(axis, (len(streams.t), 3)) for axis in np.eye(3)]
+    return _apart(streams, between, [*body, *_scaled(streams.nu[:, 3:])])[0][3:6]
+
+
+def tests_of(streams: Streams, config: Config, fit: Fit) -> list[Test]:
+    """Whether a scale of the angular velocities moves what was fitted to them by more than its
+    standard deviation: inertia and linear damping by as much, quadratic damping by twice that."""
+    if not streams.has_pose:
+        return []
+    scale, moved = scale_of(streams, config), 0.0
+    inertia = np.diag(fit.fitted.dynamics.body.mass_matrix)
+    for name, value, std in zip(fit.names, fit.values.tolist(), fit.std.tolist(), strict=True):
+        c = parse(name) if name in fit.given.estimate else None
+        if c is not None and c.is_diagonal and c.row >= 3:
+            size = abs(value) + inertia[c.row] * c.is_added_mass
+            times = 1.0 if c.is_added_mass or c.left == ONE else 2.0
+            moved = max(moved, times * size * float(np.abs(scale[c.row - 3])) / std)
+    sizes = ", ".join(f"{c} by {100.0 * x:.1f} %" for c, x in zip("pqr", scale.tolist()) if x)
+    failure = (
+        f"the angular velocities turn too far beside the attitude, {sizes}, which moves a "
+        f"coefficient by up to {moved:.1f} standard deviations: calibrate the gyro"
+    )
+    return [Test("angular velocities: scale", moved, 1.0, failure)]
+
+
 def _scaled(rates: Array) -> list[Array]:
     """What a scale of each of the angular velocities (N, 3) adds to them: three of (N, 3)."""
     return [rates * axis for axis in np.eye(3)]
 
 
-def _with_gyro_set_right(
-    streams: Streams, between: Array, body: Sequence[Array], config: Config
-) -> Streams:
+def _with_gyro_set_right(streams: Streams, between: Array, config: Config) -> Streams:
     """The streams with a gyro whose scale is that of the attitude, as velocities are carried from
     one message to the next by it. Its bias is looked for elsewhere (`sensor_consistency`)."""
-    mounting = config.imu.to_body
-    gyro = streams.gyro @ mounting.T
-    rates = interpolated(streams.imu_t, gyro, streams.t)
-    of_gyro = dataclasses.replace(streams, nu=np.hstack([streams.nu[:, :3], rates]))
-    scale = _apart(of_gyro, between, [*body, *_scaled(rates)])[0][3:6]
+    scale = scale_of(streams, config, between)
     if not 0.0 < np.abs(scale).max() < _LARGEST_SCALE:
         return streams
+    mounting = config.imu.to_body
+    gyro = streams.gyro @ mounting.T
     return dataclasses.replace(streams, gyro=gyro * (1.0 - scale) @ mounting)
 
 

@@ -31,7 +31,8 @@ from rov_ident.effects.base import (
     a_reading,
 )
 from rov_ident.effects.checks import faults
-from rov_ident.model.equations import RigidBody, add_current
+from rov_ident.model.coefficients import parse
+from rov_ident.model.equations import Model, RigidBody, add_current
 
 
 def _installed_effects(taken: Mapping[str, Effect]) -> Iterator[tuple[str, Effect]]:
@@ -213,6 +214,14 @@ def of_the_vehicle(effects: Values) -> Values:
 def affects_sensors(effects: Values) -> bool:
     """Whether :func:`correct` changes anything."""
     return any(effect.name in effects for effect in _SENSE)
+
+
+def missing_terms(model: Model) -> tuple[str, ...]:
+    """The coefficients of motion that an effect has and the model has not."""
+    there = {c.place for c in model.coefficients}
+    every = [parse(name) for effect in EFFECTS.values() for name in effect.coefficients]
+    missing = {c.place: c.name for c in every if c.place not in there and not c.inputs}
+    return tuple(missing.values())
 
 
 def with_trait(trait: Trait) -> tuple[str, ...]:

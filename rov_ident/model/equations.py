@@ -18,7 +18,7 @@ gravity anywhere, off-diagonal terms included, and does no work by construction.
 many of sigma points as vector instructions), :func:`columns` the same per unit of each coefficient.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -166,6 +166,12 @@ class Model:
                 )
             theta[self.names.index(name)] = value
         return self.with_theta(theta)
+
+    def with_terms(self, names: Iterable[str]) -> "Model":
+        """The same with further coefficients, which are zero."""
+        every = sorted((*self.coefficients, *map(parse, names)), key=lambda c: not c.is_added_mass)
+        theta = np.array([self.values.get(c.name, 0.0) for c in every])
+        return Model(self.body, tuple(every), theta)
 
     def input_wrench(self, nu: Array, inputs: Array) -> Array:
         """The wrench (..., 6) of fins and propeller at nu (..., 6) for inputs (..., 4)."""

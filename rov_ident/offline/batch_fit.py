@@ -31,10 +31,10 @@ from rov_ident.core.whiteness import JUDGED_TIME
 from rov_ident.estimation.consistency import CAUSE, Test, consistency_of, worst_of
 from rov_ident.estimation.physical import Estimate, physical
 from rov_ident.estimation.shared import too_noisy
-from rov_ident.model.coefficients import AXES, MOTIONS, VELOCITIES, Coefficient
+from rov_ident.model.coefficients import MOTIONS, VELOCITIES, Coefficient
 from rov_ident.model.equations import RigidBody
 from rov_ident.model.scales import authority
-from rov_ident.offline import constancy, least_squares, maximum_likelihood, newton
+from rov_ident.offline import constancy, least_squares, maximum_likelihood, missing_terms, newton
 from rov_ident.offline.archive import Archive, ReadBag, Samples, total
 from rov_ident.offline.fit import Fit
 from rov_ident.offline.prediction_error import OpenLoop, by_chance, curves, open_loop
@@ -89,7 +89,7 @@ class _Stage(NamedTuple):
     reading_noise: Array  # (6,), too
     noise: maximum_likelihood.Noise | None = None
     slope: Array = np.zeros((2, 0))  # (2, n): as that of a Likelihood
-    memory: Array = np.zeros(6)  # likewise
+    missing: tuple[Test, ...] = ()
 
 
 def fit_batch(
@@ -135,7 +135,7 @@ def fit_batch(
         unexplained = np.where(np.isnan(found.unexplained), unexplained, found.unexplained)
         lasting = np.where(np.isnan(found.lasting), lasting, found.lasting)
         reading_noise = np.maximum(reading_noise, found.reading_noise)
-        constant += [*_of_constancy(config, prior, found), *_of_memory(found)]
+        constant += [*_of_constancy(config, prior, found), *found.missing]
         now = now.with_values(dict(zip(found.names, found.values.tolist(), strict=True)))
         parts.append({"channels": list(stage), **found.more} if settings.stages else found.more)
     say("open loop, fitted")
@@ -292,7 +292,8 @@ def _stage(
     found, covariance, asked = least.values, least.covariance, least.values
     noise = None
     unexplained, lasting = np.full((2, 6), np.nan)
-    reading_noise, slope, memory = np.zeros(6), np.zeros((2, 0)), np.zeros(6)
+    reading_noise, slope = np.zeros(6), np.zeros((2, 0))
+    missing: tuple[Test, ...] = ()
     if kind == "ml":
         if before is not None:
             start, noise = before.values, before.noise
@@ -317,7 +318,7 @@ def _stage(
         unexplained[:2] = np.nan if settings.unmeasured else unexplained[:2]
         lasting[free] = likelihood.lasting[free]
         reading_noise, slope = likelihood.reading_noise, likelihood.slope
-        memory = likelihood.memory
+        missing = missing_terms.tests_of(config.dynamics, likelihood.missing)
         more |= _numbers_of(likelihood, names, free)
         if likelihood.held.any():
             waiting = ", ".join(n for n, held in zip(names, likelihood.held, strict=True) if held)
@@ -348,7 +349,7 @@ def _stage(
         notes += _scale_notes(config, names, covariance)
     return _Stage(
         names, values, asked, covariance + beyond_driving, states, more, unexplained, lasting,
-        reading_noise, noise, slope, memory,
+        reading_noise, noise, slope, missing,
     )  # fmt: skip
 
 
@@ -440,19 +441,6 @@ def _of_constancy(config: Config, prior: Prior, found: _Stage) -> list[Test]:
         )
         for name, t, change in zip(found.names, *found.slope.tolist())
         if name in supposed and t != 0.0
-    ]  # fmt: skip
-
-
-def _of_memory(found: _Stage) -> list[Test]:
-    """Whether drag depends on the present motion alone, as the model has it."""
-    return [
-        Test(
-            f"memory of the drag: {axis}", abs(z), constancy.UNLIKELY,
-            f"the drag along {axis} seems to depend on the past motion, too, which added mass "
-            f"takes up: {CAUSE}",
-        )
-        for axis, z in zip(AXES, found.memory.tolist())
-        if z != 0.0
     ]  # fmt: skip
 
 

@@ -10,8 +10,10 @@ those of the stretches that tell, one less (Bell and McCaffrey 2002, roughly).
 """
 
 from collections.abc import Iterable
+from statistics import NormalDist
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rov_ident.core.linalg import scaled_solve
 from rov_ident.model.equations import Array
@@ -20,6 +22,8 @@ STRETCHES = 12  # of each record
 SHORTEST = 5.0  # s; of a stretch: an error of the attitude or of a command lasts less
 UNLIKELY = 3.3  # normal deviates: beyond it is one of a thousand
 _FEWEST = 3.0  # stretches that tell as much as each other: with fewer nothing is judged
+_TOLD_APART = 1e-6  # of the information, beside all others: with less, rounding decides
+_CHANCE = 0.01  # of any of several tests, in a fit of which all they ask for is not there
 
 
 def stretches_of(seconds: float) -> int:
@@ -65,24 +69,42 @@ def slopes(scores: Array, informations: Array, whole: Array) -> Array:
     return found
 
 
-def lacking(scores: Array, informations: Array, whole: Array) -> Array:
+def lacking(
+    scores: Array, informations: Array, precision: Array, off: Array, held: NDArray[np.bool_]
+) -> Array:
     """How unlikely by chance it is, as normal deviates (q,), that each of q parameters is zero that
     the model does not have; zeros where too few stretches tell.
 
-    ``scores`` (C, n + q) and ``informations`` (C, n + q, n + q) of stretches, at the estimate of
-    the n parameters of the model, whose information (n, n) is ``whole``, prior included.
+    ``scores`` (C, n + q) and ``informations`` (C, n + q, n + q) of stretches, at any estimate near
+    the likeliest one of the n parameters of the model; ``off`` (n,) are the means of their prior,
+    of the ``precision`` (n,), less that. All but the ``held`` ones (n,) are refitted beside each.
     """
-    count, n = len(scores), len(whole)
+    count, n = len(scores), len(precision)
     found = np.zeros(scores.shape[1] - n)
-    for i in range(len(found) if count >= STRETCHES else 0):
+    if count < STRETCHES:
+        return found
+    # the prior is one more stretch
+    known = np.zeros((1, *informations.shape[1:]))
+    known[0, :n, :n] = np.diag(precision)
+    scores = np.vstack([scores, np.append(precision * off, found)])
+    informations = np.concatenate([informations, known])
+    free = np.flatnonzero(~held)
+    whole = informations.sum(axis=0)
+    asked = np.column_stack([scores[:, free].sum(axis=0), whole[free, n:]])
+    step, *beside = scaled_solve(whole[np.ix_(free, free)], asked, ridge=1e-12).T
+    scores -= informations[:, :, free] @ step  # as they are at the likeliest one
+    for i in range(len(found)):
         along = np.zeros(scores.shape[1])
-        along[:n] = -scaled_solve(whole, informations[:, :n, n + i].sum(axis=0), ridge=1e-12)
-        along[n + i] = 1.0
+        along[free], along[n + i] = -beside[i], 1.0
         own, weight = scores @ along, informations @ along @ along
-        # all others' scores are zero with the prior's
-        change = float(scores[:, n + i].sum()) / max(float(weight.sum()), 1e-300)
-        found[i] = _unlikely(change, own, weight, 1)
+        if weight.sum() > _TOLD_APART * whole[n + i, n + i]:
+            found[i] = _unlikely(float(own.sum() / weight.sum()), own, weight, 1)
     return found
+
+
+def unlikely_of(count: int) -> float:
+    """The normal deviate that the largest of ``count`` tests seldom exceeds (Bonferroni)."""
+    return NormalDist().inv_cdf(1.0 - 0.5 * _CHANCE / max(count, 1))
 
 
 def _unlikely(change: float, scores: Array, weight: Array, spent: int) -> float:

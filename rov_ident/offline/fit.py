@@ -18,7 +18,7 @@ from rov_ident.estimation.online import Kind, OnlineEstimator
 from rov_ident.io import topics as inputs
 from rov_ident.io.bag_reader import Bag
 from rov_ident.model.equations import Model
-from rov_ident.offline import archive
+from rov_ident.offline import archive, missing_terms
 from rov_ident.offline.prediction_error import Curves, by_chance, curves, open_loop
 from rov_ident.reports.result import NORMAL, Figure, Result, Shown, as_json, provenance
 from rov_ident.reports.table import Table, Tables
@@ -272,7 +272,7 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
             estimator.flush()
     config, read = estimator.config, archive.of_records(records, config)
     found = config.with_values(estimator.report().by_name)
-    judged = read.as_read_by(found, config)
+    judged = read.reread(found, True)
     report = estimator.report(worst_of(bag.contradictions for bag in judged.bags))
     assert report.consistency is not None and report.beyond_driving is not None
     own = np.sqrt(np.maximum(report.std**2 - report.beyond_driving, 0.0))
@@ -286,6 +286,9 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
     ]
     before, after = open_loop(read, config), open_loop(judged, found)
     chance = by_chance(judged, found, report.names, report.covariance, states)
+    tests = Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests
+    if report.consistency.consistent:
+        tests += missing_terms.tests_at(judged, config, found, report.values)
     return Fit(
         estimator=kind,
         names=report.names,
@@ -304,4 +307,4 @@ def fit_online(records: Sequence[Record], config: Config, kind: Kind) -> Fit:
         curves=curves(read.bags, before, after),
         has_thrust=any(thrust_axes(record.samples).any() for record in records),
         beyond_driving=report.beyond_driving,
-    ).with_tests(Consistency(()).with_open_loop(before.rmse, after.rmse, chance).tests)
+    ).with_tests(tests)

@@ -46,7 +46,7 @@ from rov_ident.core.jit import floats, inlined, kernel, record
 from rov_ident.core.linalg import sandwich, widened
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.whiteness import JUDGED_TIME, summed_up
-from rov_ident.effects import EFFECTS
+from rov_ident.effects import EFFECTS, missing_terms
 from rov_ident.estimation.observer import (
     LANES,
     OBSERVER,
@@ -250,9 +250,10 @@ def _late_drag(model: Model, nu: Array, samples: Samples) -> Array:
 
 
 class Stretches(NamedTuple):
-    """Of C stretches of a record the scores (C, n + 6) and informations (C, n + 6, n + 6), of n
-    parameters and of a memory of the drag of each axis, and the covariance (n, n) that what is left
-    of errors of the attitude gives the score of all."""
+    """Of C stretches of a record the scores (C, n + q) and informations (C, n + q, n + q), of n
+    parameters, of the q - 6 terms that the model lacks (:func:`~rov_ident.effects.missing_terms`)
+    and of a memory of the drag of each axis, and the covariance (n, n) that what is left of errors
+    of the attitude gives the score of all."""
 
     scores: Array
     informations: Array
@@ -269,18 +270,22 @@ def by_stretch(
     effects: Array,
 ) -> Stretches:
     """The stretches of a record (:mod:`rov_ident.offline.constancy`)."""
-    seconds, n = float(samples["dt"].sum()), len(estimated)
+    seconds, n, m = float(samples["dt"].sum()), len(estimated), len(model.theta)
     count = constancy.stretches_of(seconds)
     nu = innovations(samples, model, noise, free, gate, effects).nu
     beside = np.concatenate([_late_drag(model, nu, samples), _tilt_errors(model, samples)], axis=2)
+    more = missing_terms(model)
+    wider = model.with_terms(more)
+    at = np.array([wider.names.index(name) for name in (*model.names, *more)], dtype=np.int64)
+    ours = np.append(at[:m], len(at) + np.arange(len(effects)))[estimated]
     found = [
-        one_pass(part, model, estimated, noise, free, gate, effects, considered=own)
+        one_pass(part, wider, np.append(ours, at[m:]), noise, free, gate, effects, considered=own)
         for part, own in zip(
             np.array_split(samples, count), np.array_split(beside, count), strict=True
         )
     ]
     informations = np.array([p.information for p in found])
-    tilt = informations[:, :n, n + 6 :]  # (C, n, 2)
+    tilt = informations[:, :n, -2:]  # (C, n, 2)
     # The covariance of the means of an error over two stretches, as long as h times it lasts.
     h = seconds / count / max(float(np.mean(samples["tilt_lasts"])), 1e-3)
     between = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) - 1.0
@@ -288,8 +293,7 @@ def by_stretch(
     alike[between < 0.0] = 2.0 * (h + np.exp(-h) - 1.0)
     alike *= float(np.mean(samples["tilt_variance"])) / h**2
     by_tilt = np.einsum("cia,dja,cd->ij", tilt, tilt, alike)
-    scores = np.array([p.score[: n + 6] for p in found])
-    return Stretches(scores, informations[:, : n + 6, : n + 6], by_tilt)
+    return Stretches(np.array([p.score[:-2] for p in found]), informations[:, :-2, :-2], by_tilt)
 
 
 class Innovations(NamedTuple):
@@ -448,7 +452,8 @@ class Likelihood:
     reading, on axes that would teach that; zero on others.
     ``slope`` (2, n): the largest slope of each parameter within a record, in normal deviates, and
     by how much it changes in that record.
-    ``memory`` (6,): whether the drag of each axis depends on the past motion, in normal deviates.
+    ``missing`` (q,): how unlikely by chance it is that each of the q - 6 terms that the model lacks
+    is zero, and that the drag of each axis depends on the present motion alone, as normal deviates.
     ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
     and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
     (a lag would smooth the noise away).
@@ -463,7 +468,7 @@ class Likelihood:
     lasting: Array
     by_axis: Array
     slope: Array
-    memory: Array
+    missing: Array
     held: NDArray[np.bool_]
     reading_noise: Array
     iterations: int
@@ -512,9 +517,6 @@ def maximise(
             cost += found.outliers * gate**2
         return found, cost if np.isfinite(cost) else np.inf
 
-    readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
-    of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
-    taught = informative_axes(config)
     step = count(1)
 
     def derivatives(theta: Array, at: Pass) -> tuple[Array, Array]:
@@ -532,19 +534,10 @@ def maximise(
         # is not right yet has valleys far from it.
         of_noise = theta  # at which the noise levels are found
         say("noise levels")
-        levels = [
-            _noise_levels(each, model_at(theta), start, free, process, theta[~own])
-            for start in starts
-        ]
-        costs = [evaluate(theta, _GATE, level)[1] for level in levels]
-        noise = levels[int(np.argmin(costs))]
+        noise = _likeliest_noise(each, model_at(theta), starts, free, process, theta[~own])
         starts = [noise, *starts[:1]] if stage == 0 else [noise]
-        noisy = readings > SHARE * wrenches
-        for i in np.flatnonzero(noisy & taught.any(axis=0)):
-            there = model_at(theta), noise, free, theta[~own]
-            noisy[i] = not _follows(each, *there, int(i), readings[i] / samples[i])
-        held = (taught & noisy).any(axis=1) & (precision > 0.0)
-        noise = replace(noise, untaught=(of_thrust & ~held[own.sum() :])[:, None] & noisy)
+        there = model_at(theta), noise, free, theta[~own]
+        noise, held, reading_noise = _without_noisy_axes(each, config, *there, precision)
         bounds = np.where(held, mean, prior.lower), np.where(held, mean, prior.upper)
         cost = partial(evaluate, gate=gate, noise=noise)
         theta = np.clip(theta, *bounds)
@@ -565,13 +558,11 @@ def maximise(
     errors = total(each(with_thrust_errors, *beside)).information[:n, n:]
     by_axis = np.zeros_like(errors)
     by_axis[~held] = inverse @ errors[~held]
-    reading_noise = np.where(noisy, readings / samples, 0.0)
     records = each(by_stretch, model_at(theta), estimated, noise, free, gate, theta[~own])
     by_tilt = sum(record.by_tilt for record in records)
-    scores = np.concatenate([record.scores for record in records])
-    informations = np.concatenate([record.informations for record in records])
+    scores, informations = _together(records)
     by_stretches = constancy.scatter(scores[:, :n])
-    memory = constancy.lacking(scores, informations, curvature)
+    missing = constancy.lacking(scores, informations, precision, mean - theta, held)
     scatters = at.scatter + by_tilt, by_stretches + by_tilt
     bound, covariance = _with_consider_parameters(at.information, scatters, precision, held)
     found = [
@@ -579,7 +570,7 @@ def maximise(
     ]
     slope = constancy.worst(found, n) * ~held  # what keeps its prior suits no stretch
     return Likelihood(
-        theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, memory, held,
+        theta, asked, covariance, bound, noise, at, lasting, by_axis, slope, missing, held,
         reading_noise, steps, converged,
     )  # fmt: skip
 
@@ -598,6 +589,70 @@ def _first_levels(config: Config, process: bool, also: Noise | None) -> list[Noi
     # search would stay there; from far above it ends before it is there.
     doubtful = np.maximum(stated.floor, (_DOUBTFUL * authority(config.dynamics)) ** 2)
     return [stated, replace(stated, floor=doubtful)]
+
+
+def _likeliest_noise(
+    each: Mapper,
+    model: Model,
+    starts: Sequence[Noise],
+    free: NDArray[np.bool_],
+    process: bool,
+    effects: Array,
+) -> Noise:
+    """The likeliest of the levels that the search finds from each of some others."""
+    levels = [_noise_levels(each, model, start, free, process, effects) for start in starts]
+    if len(levels) == 1:
+        return levels[0]
+    costs = [np.sum(each(noise_cost, model, level, free, effects)) for level in levels]
+    return levels[int(np.argmin(costs))]
+
+
+def _without_noisy_axes(
+    each: Mapper,
+    config: Config,
+    model: Model,
+    noise: Noise,
+    free: NDArray[np.bool_],
+    effects: Array,
+    precision: Array,
+) -> tuple[Noise, NDArray[np.bool_], Array]:
+    """The noise, with axes that teach thrusters nothing as noise of the reading would; which
+    parameters (n,) are held, as only such axes teach them; and the variance density (6,) of that
+    noise [N2 s, (N m)2 s]."""
+    readings, wrenches, samples = np.sum(list(each(_wrench_densities)), axis=0)
+    taught = informative_axes(config)
+    noisy = readings > SHARE * wrenches
+    for i in np.flatnonzero(noisy & taught.any(axis=0)):
+        reading = readings[i] / samples[i]
+        noisy[i] = not _follows(each, model, noise, free, effects, int(i), reading)
+    held = (taught & noisy).any(axis=1) & (precision > 0.0)
+    of_thrust = np.array([bool(EFFECTS[name].act) for name, _ in config.estimate_effects], bool)
+    learning = of_thrust & ~held[len(held) - len(of_thrust) :]
+    noise = replace(noise, untaught=learning[:, None] & noisy)
+    return noise, held, np.where(noisy, readings / samples, 0.0)
+
+
+def missing_at(
+    each: Mapper, config: Config, model: Model, values: Array, free: NDArray[np.bool_]
+) -> Array:
+    """As the ``missing`` (q,) of :class:`Likelihood`, at the ``values`` (n,) that another estimator
+    has found, which are those of the ``model``."""
+    prior = prior_of(config, effects=True)
+    precision, effects = 1.0 / prior.std**2, values[prior.estimated >= len(model.theta)]
+    # one search is enough: what is judged is judged by its scatter between stretches
+    noise = _likeliest_noise(each, model, [assumed(config)], free, True, effects)
+    there = model, noise, free, effects
+    noise, held, _ = _without_noisy_axes(each, config, *there, precision)
+    records = each(by_stretch, model, prior.estimated, noise, free, _GATE, effects)
+    return constancy.lacking(*_together(records), precision, prior.mean - values, held)
+
+
+def _together(records: Sequence[Stretches]) -> tuple[Array, Array]:
+    """Scores and informations of the stretches of all records."""
+    return (
+        np.concatenate([record.scores for record in records]),
+        np.concatenate([record.informations for record in records]),
+    )
 
 
 def _with_consider_parameters(

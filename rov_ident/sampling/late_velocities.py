@@ -30,19 +30,27 @@ class LateVelocities:
         pose of that time is known."""
         known, at = self._known, t - self.delay
         known.append((t, message))
-        while len(known) > 2 and known[1][0] <= at:
+        while len(known) > 3 and known[2][0] <= at:
             known.popleft()
         if not at < t:  # also where a delay is less than the rounding of t
             return t, message
-        begin, before = known[0]
-        end, after = known[1] if len(known) > 1 else known[0]
+        i = 1 if len(known) > 2 and known[1][0] <= at else 0
+        begin, before = known[i]
+        end, after = known[i + 1] if len(known) > 1 else known[0]
         if not begin <= at < end or end - begin > LONGEST_INTERVAL:
             return None
         share = (at - begin) / (end - begin)
+        angular = _between(before.angular, after.angular, share)
+        if i and begin - known[0][0] <= LONGEST_INTERVAL:
+            # At 4 Hz a straight line is off by 6 % of a rate that oscillates at 0.45 Hz.
+            earlier, previous = known[0]
+            change = (after.angular - before.angular) / (end - begin)
+            change -= (before.angular - previous.angular) / (begin - earlier)
+            angular = angular + change / (end - earlier) * (at - begin) * (at - end)
         return at, message._replace(
             position=_between(before.position, after.position, share),
             orientation=_attitude(before, after, at - begin, end - at),
-            angular=_between(before.angular, after.angular, share),
+            angular=angular,
         )
 
 
