@@ -429,3 +429,29 @@ def test_late_thrust_is_told_where_nothing_in_the_model_is_late(tmp_path, kind):
     if kind == "rls":  # where the model has a lag, of any estimator the same is asked
         late = ri.fit(tmp_path / "late.mcap", configuration.from_parameters(parameters), kind)
         assert "motion behind the wrench" not in [test.name for test in late.consistency.tests]
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.02])
+def test_a_gyro_that_turns_too_far_is_told(tmp_path, scale):
+    """Damping in yaw was ten standard deviations off, in a fit that was said to agree."""
+    rng = np.random.default_rng(5)
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_rate=10.0)
+    truth = sea.dive(vehicle, unknown, "pilot", 80.0, rng)
+    messages = sea.measured(truth, unknown, rng)
+
+    def scaled(message):
+        of = [f for f in ("angular", "angular_velocity") if hasattr(message, f)]
+        return message._replace(**{f: (1.0 + scale) * getattr(message, f) for f in of})
+
+    told = sea.told(vehicle, unknown, rng)
+    told["vehicle"] |= {"mass_std": 0.0, "inertia_std": 0.0, "cob_std": 0.0}
+    told.setdefault("wrench", {})["scale_std"] = 0.0
+    bag, file = tmp_path / "dive.mcap", tmp_path / "vehicle.yaml"
+    write_messages(bag, [(arrival, role, scaled(m)) for arrival, role, m in messages])
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": told}}))
+    tests = {test.name: test for test in ri.fit(bag, file, "rls").consistency.tests}
+    test = tests["angular velocities: scale"]
+    assert test.passed == (not scale)
+    if scale:
+        told_of = float(test.failure.split("r by ")[1].split(" %")[0])
+        assert told_of == pytest.approx(100.0 * scale / (1.0 + scale), abs=0.15)

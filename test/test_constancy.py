@@ -126,6 +126,24 @@ def remembering(vehicle, truth, rng):
     return 0.1 * (drag - late), None
 
 
+def written(folder, messages, truth, acting, told):
+    """Bag and configuration of a dive on which a wrench (N, 6) has acted, too, that is not read."""
+    begin = messages[0][2].stamp
+
+    def without(message):
+        """A wrench as read, less what is hidden: the vehicle moved as if it had acted, too."""
+        k = np.searchsorted(truth.t - truth.t[0], 1e-9 * (message.stamp - begin))
+        force, torque = acting[min(k, len(acting) - 1)].reshape(2, 3)
+        return message._replace(
+            force=message.force - FLU * force, torque=message.torque - FLU * torque
+        )
+
+    bag, file = folder / "dive.mcap", folder / "vehicle.yaml"
+    write_messages(bag, [(a, r, without(m) if r == "wrench" else m) for a, r, m in messages])
+    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": told}}))
+    return bag, file
+
+
 HIDDEN = {"leak": leaking, "memory": remembering}
 
 
@@ -142,20 +160,8 @@ def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_rate=10.0)
     truth = sea.dive(vehicle, unknown, "six-axis", 70.0, rng)
     messages = sea.measured(truth, unknown, rng)
-    file, bag = tmp_path / "vehicle.yaml", tmp_path / "dive.mcap"
-    file.write_text(yaml.safe_dump({"/**": {"ros__parameters": sea.told(vehicle, unknown, rng)}}))
-    begin = messages[0][2].stamp
     acting, size = HIDDEN[hidden](vehicle, truth, rng) if hidden else (np.zeros((1, 6)), None)
-
-    def without(message):
-        """A wrench as read, less what is hidden: the vehicle moved as if it had acted, too."""
-        k = np.searchsorted(truth.t - truth.t[0], 1e-9 * (message.stamp - begin))
-        force, torque = acting[min(k, len(acting) - 1)].reshape(2, 3)
-        return message._replace(
-            force=message.force - FLU * force, torque=message.torque - FLU * torque
-        )
-
-    write_messages(bag, [(a, r, without(m) if r == "wrench" else m) for a, r, m in messages])
+    bag, file = written(tmp_path, messages, truth, acting, sea.told(vehicle, unknown, rng))
     found = ri.fit(bag, file, "ml").consistency
     tests = {test.name: test for test in found.tests}
     assert "constancy of ocean_current.north" in tests and "memory of the drag: X" in tests
@@ -168,3 +174,24 @@ def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     if hidden == "leak":
         changed = tests["constancy of buoyancy.delta"].failure.split(" by ")[1].split()[0]
         assert float(changed) == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("seed", "coupling"), [(0, 0.0), (0, 0.03), *more((1, 0.0), (1, 0.02), (2, 0.0), (2, 0.02))]
+)
+def test_a_recursive_fit_says_what_the_model_lacks(tmp_path, seed, coupling):
+    """Y_r [N s] and N_v, a hundredth of what drives sway and yaw."""
+    rng = np.random.default_rng([seed, 77])
+    vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_rate=10.0)
+    truth = sea.dive(vehicle, unknown, "six-axis", 70.0, rng)
+    messages = sea.measured(truth, unknown, rng)
+    acting = np.zeros((len(truth.t), 6))
+    acting[:, 1], acting[:, 5] = coupling * truth.state[:, 12], coupling * truth.state[:, 8]
+    bag, file = written(tmp_path, messages, truth, acting, sea.told(vehicle, unknown, rng))
+    found = ri.fit(bag, file, "rls").consistency
+    missing = {t.name[14:]: t.value for t in found.tests if t.name.startswith("missing term: ")}
+    assert found.consistent == (not coupling), found.sentence
+    if missing and coupling:
+        assert max(missing, key=lambda name: missing[name])[:3] in ("Y_r", "N_v")
+    else:
+        assert len(missing) > 30

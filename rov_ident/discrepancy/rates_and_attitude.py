@@ -110,9 +110,9 @@ def tests_of(streams: Streams, config: Config, fit: Fit) -> list[Test]:
     for name, value, std in zip(fit.names, fit.values.tolist(), fit.std.tolist(), strict=True):
         c = parse(name) if name in fit.given.estimate else None
         if c is not None and c.is_diagonal and c.row >= 3:
-            size = abs(value) + inertia[c.row] * c.is_added_mass
+            size = abs(value) + float(inertia[c.row]) * c.is_added_mass
             times = 1.0 if c.is_added_mass or c.left == ONE else 2.0
-            moved = max(moved, times * size * float(np.abs(scale[c.row - 3])) / std)
+            moved = max(moved, times * size * abs(float(scale[c.row - 3])) / std)
     sizes = ", ".join(f"{c} by {100.0 * x:.1f} %" for c, x in zip("pqr", scale.tolist()) if x)
     failure = (
         f"the angular velocities turn too far beside the attitude, {sizes}, which moves a "
