@@ -180,7 +180,7 @@ def test_what_hides_in_other_parameters_is_told(tmp_path, seed, hidden):
     ("seed", "coupling"), [(0, 0.0), (0, 0.03), *more((1, 0.0), (1, 0.02), (2, 0.0), (2, 0.02))]
 )
 def test_a_recursive_fit_says_what_the_model_lacks(tmp_path, seed, coupling):
-    """Y_r [N s] and N_v, a hundredth of what drives sway and yaw."""
+    """Y_r and N_v of some hundredths of a newton second, in the wrench less than a hundredth."""
     rng = np.random.default_rng([seed, 77])
     vehicle, unknown = sea.draw_vehicle(rng), sea.Sea(odometry_rate=10.0)
     truth = sea.dive(vehicle, unknown, "six-axis", 70.0, rng)

@@ -20,7 +20,7 @@ from rov_ident.core.errors import UserError, refuse_ignored, require
 from rov_ident.core.messages import DRIVE, WRENCH, Message
 from rov_ident.core.progress import Progress, silent
 from rov_ident.core.threads import one_blas_thread
-from rov_ident.discrepancy import rates_and_attitude, velocity_sensor
+from rov_ident.discrepancy import velocity_sensor
 from rov_ident.estimation.consistency import Test, tests_of_sensors, worst_of
 from rov_ident.estimation.online import ESTIMATORS
 from rov_ident.experiment import data_quality, design, messages_alone
@@ -208,6 +208,8 @@ def _judged(found: Fit, given: Config, validate: File, fitted: list[Path], say: 
 def _message_tests(paths: Sequence[Path], fit: Fit, late: bool) -> list[Test]:
     """Tests of sensors and clocks on the first messages of each bag: the worst result of each;
     ``late``: whether the model that was fitted has thrust or velocities that are."""
+    from rov_ident.discrepancy import rates_and_attitude  # here: it loads what only explain needs
+
     worst: dict[str, Test] = {}
     config = fit.given
     for path in paths:
