@@ -72,8 +72,8 @@ def slopes(scores: Array, informations: Array, whole: Array) -> Array:
 def lacking(
     scores: Array, informations: Array, precision: Array, off: Array, held: NDArray[np.bool_]
 ) -> Array:
-    """How unlikely by chance it is, as normal deviates (q,), that each of q parameters is zero that
-    the model does not have; zeros where too few stretches tell.
+    """How unlikely the data are, as normal deviates (q,), if each of q parameters is zero that the
+    model does not have; zeros where too few stretches tell.
 
     ``scores`` (C, n + q) and ``informations`` (C, n + q, n + q) of stretches, at any estimate near
     the likeliest one of the n parameters of the model; ``off`` (n,) are the means of their prior,

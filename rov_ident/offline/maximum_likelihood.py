@@ -432,7 +432,7 @@ def _follows(
         floor = np.where(np.arange(6) == axis, density, noise.floor)
         found = each(noise_cost, model, replace(noise, floor=floor), free, effects)
         costs.append(sum(cost[axis] for cost in found))
-    return bool(costs[0] <= costs[1])
+    return bool(costs[0] < costs[1])  # neither where nothing is measured along it
 
 
 # ------------------------------------------------------------------ the estimate
@@ -452,8 +452,8 @@ class Likelihood:
     reading, on axes that would teach that; zero on others.
     ``slope`` (2, n): the largest slope of each parameter within a record, in normal deviates, and
     by how much it changes in that record.
-    ``missing`` (q,): how unlikely by chance it is that each of the q - 6 terms that the model lacks
-    is zero, and that the drag of each axis depends on the present motion alone, as normal deviates.
+    ``missing`` (q,): how unlikely the data are, as normal deviates, if each of the q - 6 terms that
+    the model lacks is zero, and if the drag of each axis depends on the present motion alone.
     ``held`` (n,): what kept its prior, as it would be learnt from such axes: their coefficients,
     and factors of the thrust there. Other parameters of thrusters are learnt from the other axes
     (a lag would smooth the noise away).
